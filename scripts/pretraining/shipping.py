@@ -13,11 +13,8 @@ from v2p_data.experts.pretrained import CARD_FILE, FOLDER
 from v2p_data.pipeline.artifact import write_json_atomically
 from v2p_data.pipeline.fingerprint import file_digest
 
-MADE_BY = {
-    "taught": "imitation of a scripted program on {tasks} random objects at once",
-    "best": "imitation of a scripted program on {tasks} random objects at once, then {steps:,} steps of PPO",
-    "last": "imitation of a scripted program on {tasks} random objects at once, then {steps:,} steps of PPO",
-}
+TAUGHT = "imitation of a scripted program on {tasks} random objects at once"
+BY_PPO = f"{TAUGHT}, then {{steps:,}} steps of PPO"
 PLACES = {"taught": "taught", "best": "ppo", "last": "ppo/last"}
 
 
@@ -35,7 +32,9 @@ def ship(runs: list[Path], folder: Path = FOLDER) -> dict[str, Any]:
             Expert.load(path.parent / PLACES[name]).save(out)
             _halve(out / WEIGHTS_FILE)
             card[record["kind"]] = {
-                "made_by": MADE_BY[name].format(**{"steps": 0} | record | record.get("ppo", {})),
+                "made_by": (TAUGHT if name == "taught" else BY_PPO).format(
+                    **{"steps": 0} | record | record.get("ppo", {})
+                ),
                 "chosen_at": round(success, 4),
                 "least": round(float(np.min(rates["end"])), 4),
                 "chosen_on": f"{len(rates['end'])} random tasks that nothing was trained on, 24 episodes each",

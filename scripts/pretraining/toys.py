@@ -1,7 +1,7 @@
-"""Random tasks of one kind: what is moved, and what it is moved to, in many sizes and forms.
+"""Random tasks of one kind: the moved object and the other one, in many sizes and forms.
 
-Task `number` of a kind follows from the seed, the kind and the number alone. Sizes are drawn blindly; what the
-gripper cannot take is refused as a video's would be.
+Task `number` of a kind follows from the seed, the kind and the number alone. Sizes are drawn without a look at the
+gripper. The simulator refuses objects that do not suit the robot, as it does those of videos.
 """
 
 from dataclasses import dataclass, replace
@@ -14,14 +14,11 @@ from numpy.random import Generator
 
 from v2p_data.geometry.mesh import Size, mesh_for, parts_for, write_obj
 from v2p_data.kinds import KINDS, Kind
-from v2p_data.scene.scene import FLOOR_MAX_M, Scene, SceneObject
+from v2p_data.scene.scene import FLOOR_MAX_M, SceneObject
 from v2p_data.seeds import rng_for
 from v2p_data.sim.model.world import WALL_MAX_M
-from v2p_data.task.benchmark import load_benchmark
-from v2p_data.task.generate import TaskConfig
-from v2p_data.task.sandbox.sandbox import class_name
+from v2p_data.task.benchmark import load_benchmark, task_of
 from v2p_data.task.task import TaskBundle
-from v2p_data.task.templates.write import write_samples
 
 OPENING_M = 0.083
 """What fits between the open pads."""
@@ -60,22 +57,6 @@ def random_task(kind: Kind, number: int, seed: int, folder: Path) -> TaskBundle:
         folder=folder / title,
     )
     return task_of(scene)
-
-
-def task_of(scene: Scene) -> TaskBundle:
-    """Return the task that the templates' first sample makes of a scene."""
-    row = KINDS[scene.kind]
-    code = write_samples(scene, 1)[0]
-    return TaskBundle(
-        title=scene.title,
-        description=scene.description,
-        kind=scene.kind,
-        class_name=class_name(code),
-        code=code,
-        scene=scene,
-        horizon_steps=row.horizon_steps or TaskConfig().horizon_steps,
-        motion_scale=row.motion_scale,
-    )
 
 
 _WORDS: dict[Kind, str] = {
@@ -153,7 +134,7 @@ def _graspable(rng: Generator, longest: float = 0.2, tallest: float = 0.22) -> B
 def _stood(
     rng: Generator, low: float, high: float, steep: float = 2.0, tallest: float = 0.2
 ) -> Body:
-    """Return what stands on the table and is pushed: box, cylinder, cup or bin."""
+    """Return the shape of an object that is pushed: a box, a cylinder, a cup or a bin."""
     forms = ["box", "cylinder", "cup", "bin"]
     form: Form = str(rng.choice(forms, p=[0.5, 0.3, 0.12, 0.08]))  # type: ignore[assignment]
     a, b = _u(rng, low, high), _u(rng, low, high)
@@ -198,7 +179,7 @@ def _slid(rng: Generator) -> tuple[Body, Body]:
 
 
 def _covering(rng: Generator) -> tuple[Body, Body]:
-    """Return a cover and what fits under it however the sizes of an episode are drawn."""
+    """Return a cover and an object that fits under it, for all sizes that an episode may draw."""
     d, high = _u(rng, 0.064, 0.08), _u(rng, 0.055, 0.14)
     room = 0.45 * d - WALL_MAX_M
     form: Form = str(rng.choice(["box", "cylinder", "sphere"]))  # type: ignore[assignment]

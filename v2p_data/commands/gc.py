@@ -125,7 +125,7 @@ def _record_of(folder: Path) -> Record | None:
 
 
 def _is_as_made(folder: Path, record: Record) -> bool:
-    """Return whether a result bears its own name and holds nothing but what its stage left there, as it was left."""
+    """Return whether a result bears its own name and holds the files of its record alone, with equal contents."""
     held = [p for p in folder.rglob("*") if p.is_symlink() or not p.is_dir()]
     files = record.files or {}
     own_name = f"{record.stage}/{record.item}-{record.fingerprint}"

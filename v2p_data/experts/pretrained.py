@@ -19,7 +19,7 @@ CARD_FILE = "card.json"
 
 
 def card(folder: Path = FOLDER) -> dict[str, Any]:
-    """Return what is known of each kind's expert: how it was learned, success on held-out objects, its digest."""
+    """Return the card: per kind how its expert was learned, its success on held-out objects, its digest."""
     path = folder / CARD_FILE
     return read_object(path, "install the package anew") if path.is_file() else {}
 

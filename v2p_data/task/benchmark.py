@@ -47,13 +47,14 @@ def load_benchmark(name: str, folder: Path = FOLDER) -> TaskBundle:
         words = " ".join(str(error).split())
         raise V2PError(f"{path} is no benchmark task: {type(error).__name__}: {words}") from error
     reference = path.with_suffix(".py")
-    code = (
-        reference.read_text(encoding="utf-8")
-        if reference.is_file()
-        else write_samples(scene, 1)[0]
-    )
+    return task_of(scene, reference.read_text(encoding="utf-8") if reference.is_file() else "")
+
+
+def task_of(scene: Scene, code: str = "") -> TaskBundle:
+    """Return the task of a scene, by its own code or else by the templates' first sample."""
+    code = code or write_samples(scene, 1)[0]
     return TaskBundle(
-        title=name,
+        title=scene.title,
         description=scene.description,
         kind=scene.kind,
         class_name=class_name(code),
